@@ -5,7 +5,8 @@
 Prints how many converge, iterations, and which of the rest are too short for their side; of the pegs also milliseconds
 of a warm step beside those of the same rod far from all pegs (medians of 21, compiled). Branches through the same
 scenes as the cables become heavier, beside paths. Cables through a clip, pressed aside by a cylinder. Cables over pipes
-that lie on a floor, and harnesses. Cables under loads without a potential, beside a floor and a wall.
+that lie on a floor, and harnesses; cables that cross and touch one another, also milliseconds. Cables under loads
+without a potential, beside a floor and a wall.
 Of friction the pull of a taut cable half around a cylinder beside exp(mu pi), and of one that is drawn a little over a
 floor, and back, beside its closed form; of ropes over a cylinder, which nothing else holds, how many are found at rest.
 """
@@ -279,6 +280,36 @@ def crossing(count: int, gap: float = 0.0, seed: int = 0, segments: int = 32) ->
     _tell(f"harnesses across a pipe up to {1000 * gap:g} mm above a floor, seed {seed}", harnesses, segments)
 
 
+def touching_harness(rng: np.random.Generator, cables: int) -> rj.Harness:
+    """Cables that cross one another, one above the other, over a pipe on a floor, and may touch one another."""
+    around = {
+        "gravity": (0, 0, -9.81),
+        "obstacles": [rj.Plane((0, 0, 0), (0, 0, 1)), rj.Cylinder((0.3, -0.5, 0.03), (0.3, 0.5, 0.03), 0.02)],
+    }
+    scenes = {}
+    for k, side in enumerate(np.linspace(-1, 1, cables)):
+        begin, end, height = 0.06 * side, rng.uniform(0, 0.02) - 0.06 * side, 0.08 + 0.02 * k
+        along = rj.frame((0.6, end - begin, 0))
+        rod = rj.Rod.circular(np.hypot(0.6, end - begin) * rng.uniform(1.02, 1.12), 4e-3, 1e7, 0.5, density=1200)
+        supports = rj.Clamp((0, begin, height), along), rj.Clamp((0.6, end, height), along)
+        scenes[f"cable {k + 1}"] = rj.Scene(rod, *supports, **around)
+    return rj.Harness(scenes, contact=True)
+
+
+def touching(count: int, segments: int = 24) -> None:
+    """Also milliseconds of each, compiled."""
+    for cables in (2, 3):
+        rng = np.random.default_rng(cables)
+        harnesses = [touching_harness(rng, cables) for _ in range(count)]
+        _tell(f"{cables} cables that cross and touch", harnesses, segments)
+        seconds = []
+        for harness in harnesses:
+            begin = time.perf_counter()
+            rj.solve(harness, segments=segments, strain_limit=None)
+            seconds.append(time.perf_counter() - begin)
+        print(f"  milliseconds median {1000 * np.median(seconds):.0f}, 90 % {1000 * np.percentile(seconds, 90):.0f}")
+
+
 def turned_scene(rng: np.random.Generator, kind: str, end: str, size: float) -> rj.Scene:
     """A cable under a load without a potential, of a part of `size`, beside a floor and a wall."""
 
@@ -453,6 +484,7 @@ if __name__ == "__main__":
     branched(scenes // 4)
     crossing(scenes)
     crossing(scenes, gap=0.012)
+    touching(scenes // 8)
     turned(scenes)
     turned(scenes, size=4.0)
     branches(scenes)

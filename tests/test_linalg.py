@@ -496,7 +496,7 @@ def test_borders_side_by_side_with_other_contacts_in_need():
         compliance = jnp.asarray(np.diag([-1.0, -2.0]))
         found = Border(jnp.zeros((4, k, 9)), compliance, far, jnp.asarray(is_needed), jnp.asarray(0.1))
         parts = rng.normal(size=(found.size, found.size)) / found.size
-        parts *= np.concatenate([np.ones(k, bool), np.tile(is_needed, 5)])
+        parts *= np.concatenate([np.ones(k, bool), np.repeat(is_needed, 5)])
         return found, parts.T @ parts * 5 - np.asarray(found.whole_compliance())
 
     borders, matrices = zip(*(border(needed) for needed in (0, 3, p)), strict=True)

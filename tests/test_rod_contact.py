@@ -11,7 +11,8 @@ from scipy.optimize import brentq
 import rodjax
 from rodjax import Body, Clamp, Harness, Joint, Newton, Pin, Plane, PointForce, Rod, Scene, plot
 from rodjax.analysis.sensitivity import moved
-from rodjax.solving.rod_contact import pairs_of
+from rodjax.linalg.far_rows import SIGNS
+from rodjax.solving.rod_contact import Between, pairs_of
 from rodjax.solving.rod_contact_results import touching_rods
 
 RADIUS, LENGTH, YOUNGS_MODULUS = 0.01, 1.0, 1e7
@@ -398,3 +399,29 @@ def test_what_a_structure_is_changes_nothing_for_contacts():
     for name in ("left", "right"):
         assert float(found.rod_contacts["upper", name].forces[:, 2].sum()) > 0.1
     assert not np.any(found.rod_contacts["left", "right"].forces)
+
+
+@pytest.mark.parametrize("closed", [3, 12], ids=["few", "more than a few"])
+def test_contacts_are_solved_with_those_that_are_needed_first(closed):
+    """As all together, and the multipliers stand where the contacts do; to rounding, of numbers of order 1."""
+    rng, count = np.random.default_rng(closed), 20
+    is_closed = np.isin(np.arange(count), rng.permutation(count)[:closed])
+    pressures = np.where(is_closed, 0.0, rng.random(count) * (rng.random(count) < 0.1))  # open ones that still curve
+    begin = Between(*map(jnp.asarray, (rng.normal(size=count), pressures, is_closed)), ())
+    contacts = begin.first_needed(jnp.asarray(is_closed), jnp.full(count, 0.1))
+    assert int(contacts.total) == np.sum(is_closed | (pressures > 0)) == closed + np.sum(pressures > 0)
+    by_columns = rng.normal(size=(7, count, 5)) / 4
+    by_columns[:, ~is_closed, 0], by_columns[:, ~is_closed & (pressures == 0)] = 0.0, 0.0
+    compliances = np.stack([np.where(is_closed, 0.1, 1.0), *(np.full(count, sign) for sign in SIGNS)], axis=1)
+    given = np.zeros((count, 5))
+    given[:, 0] = np.where(is_closed, 0.1 * pressures - begin.gaps, 0.0)
+
+    def matrix(order) -> np.ndarray:
+        columns = by_columns[:, order].reshape(7, -1)
+        return -np.diag(compliances[order].reshape(-1)) - columns.T @ columns
+
+    inverse, excess = contacts.inverse(jnp.asarray(matrix(contacts.order)))
+    found = contacts.of_model(inverse @ contacts.right)
+    whole = matrix(np.arange(count))
+    np.testing.assert_allclose(found, np.linalg.solve(whole, given.reshape(-1)), atol=1e-12)
+    assert excess == np.sum(np.linalg.eigvalsh(whole) < 0) - np.sum(compliances > 0)

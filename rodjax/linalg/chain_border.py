@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.linalg.far_rows import SIGNS, FarRows
+from rodjax.linalg.far_rows import FarRows, compliances_of
 from rodjax.linalg.small_matrices import inverse_matrix
 from rodjax.programs.parts import traced_once
 
 # A border is solved with the first so many contacts, or with all.
-FEW = (0, 16)
+FEW = (0, 8)
 T = TypeVar("T")
 # Columns by rotations, by positions, and what is solved for them.
 Columns = tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k n 3"]]
@@ -26,7 +26,7 @@ Columns = tuple[Float[Array, "b k m"], Float[Array, "k n+1 3"], Float[Array, "k 
 
 class Border(eqx.Module):
     """`by_rotation`, `compliance`: of the border of the system. `far`: contacts between elements, first those that are
-    likely to be needed, `None` without such; `is_closed`, `contact_compliance`: of these.
+    needed, `None` without such; `is_closed`, `contact_compliance`: of these.
     """
 
     by_rotation: Float[Array, "b k m"]
@@ -57,9 +57,9 @@ class Border(eqx.Module):
             return self.compliance
         assert self.is_closed is not None
         assert self.contact_compliance is not None
-        k, signs = len(self.compliance), jnp.repeat(jnp.asarray(SIGNS), len(self.far.elements))
+        k = len(self.compliance)
         # An open contact is a number by itself.
-        compliances = jnp.concatenate([jnp.where(self.is_closed, self.contact_compliance, 1.0), signs])
+        compliances = compliances_of(jnp.where(self.is_closed, self.contact_compliance, 1.0))
         whole = jnp.zeros((self.size, self.size), compliances.dtype)
         return whole.at[:k, :k].set(self.compliance).at[k:, k:].set(jnp.diag(compliances))
 
@@ -79,46 +79,34 @@ class Border(eqx.Module):
     ) -> tuple[Columns, Float[Array, "k k"], Int[Array, ""]]:
         """Solutions, matrix of the border and a count, of the border with the contacts that are needed."""
 
-        def spread(part: "Border", at: np.ndarray) -> tuple[Columns, Float[Array, "k k"], Int[Array, ""]]:
+        def spread(part: "Border") -> tuple[Columns, Float[Array, "k k"], Int[Array, ""]]:
             (x, u, force), matrix, count = solved(part)
-
-            def wide(columns: Float[Array, "j *c"]) -> Float[Array, "k *c"]:
-                return jnp.zeros_like(columns, shape=(self.size, *columns.shape[1:])).at[at].set(columns)
-
-            solutions = jnp.swapaxes(wide(jnp.swapaxes(x, 0, 1)), 0, 1), wide(u), wide(force)
-            return solutions, (-self.whole_compliance()).at[np.ix_(at, at)].set(matrix), count
+            others = self.size - part.size
+            x = jnp.pad(x, ((0, 0), (0, others), (0, 0)))
+            u, force = (jnp.pad(columns, ((0, others), (0, 0), (0, 0))) for columns in (u, force))
+            matrix = (-self.whole_compliance()).at[: part.size, : part.size].set(matrix)
+            return (x, u, force), matrix, count
 
         return self._by_need(solved, spread)
 
     def inverse(self, matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
         """Of a matrix as `by_need` has it."""
 
-        def spread(part: "Border", at: np.ndarray) -> Float[Array, "k k"]:
-            alone = jnp.diag(1 / jnp.diagonal(matrix))
-            return alone.at[np.ix_(at, at)].set(inverse_matrix(matrix[np.ix_(at, at)]))
+        def spread(part: "Border") -> Float[Array, "k k"]:
+            alone, first = jnp.diag(1 / jnp.diagonal(matrix)), slice(part.size)
+            return alone.at[first, first].set(inverse_matrix(matrix[first, first]))
 
         return self._by_need(lambda part: inverse_matrix(matrix), spread)
 
-    def _by_need(self, whole: Callable[["Border"], T], spread: Callable[["Border", np.ndarray], T]) -> T:
+    def _by_need(self, whole: Callable[["Border"], T], spread: Callable[["Border"], T]) -> T:
         if self.far is None:
             return whole(self)
-        p, k = len(self.far.elements), len(self.compliance)
-        few = [count for count in FEW if count < p]
-        branches: list[Callable] = []
-        for count in few:
-            places = k + np.arange(5)[:, None] * p + np.arange(count)[None]
-            at = np.concatenate([np.arange(k), places.reshape(-1)])
-            branches.append(lambda count=count, at=at: spread(self._with_first(count), at))
-        level = _largest_of_all(jnp.sum(jnp.asarray(self._needed) > np.array(few))) if few else 0
-        return jax.lax.switch(level, [*branches, lambda: whole(self)])
-
-    @property
-    def _needed(self) -> Int[Array, ""]:
-        """From the first contact on, to the last one that is closed or has curvature."""
-        assert self.far is not None
+        few = [count for count in FEW if count < len(self.far.elements)]
+        branches: list[Callable] = [lambda count=count: spread(self._with_first(count)) for count in few]
         assert self.is_closed is not None
-        curves = (self.far.by_rotation[1:] != 0).any((0, 1, 2)) | (self.far.by_position[1:] != 0).any((0, 1, 2))
-        return jnp.max(jnp.where(self.is_closed | curves, np.arange(1, len(self.is_closed) + 1), 0))
+        needed = jnp.sum(self.far.are_needed(self.is_closed))
+        level = _largest_of_all(jnp.sum(needed > np.array(few))) if few else 0
+        return jax.lax.switch(level, [*branches, lambda: whole(self)])
 
     def _with_first(self, count: int) -> "Border":
         assert self.far is not None

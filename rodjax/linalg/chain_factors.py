@@ -85,7 +85,7 @@ class ChainFactors(eqx.Module):
         far, k = self.contacts.far, len(self.whole.compliance)
         if far is None:
             return self.complement
-        at = np.arange(k, k + len(far.elements))
+        at = k + 5 * np.arange(len(far.elements))
         is_closed = self.contacts.is_closed[far.row, far.elements]
         harder = jnp.where(is_closed, (1 - HARD) * self.contacts.contact_compliance, 0.0)
         return self.border.inverse(self.bordered.at[at, at].add(harder))
@@ -131,7 +131,8 @@ class ChainFactors(eqx.Module):
             # These are columns of the border.
             pulling = pulling.at[contacts.far.row].set(0.0)
             of_far = jnp.where(contacts.is_closed, -given, 0.0)[contacts.far.row, contacts.far.elements]
-            first = jnp.pad(jnp.concatenate([first, of_far]), (0, 4 * len(of_far)))
+            of_far = jnp.zeros((len(of_far), 5), of_far.dtype).at[:, 0].set(of_far)
+            first = jnp.concatenate([first, of_far.reshape(-1)])
         nodes += contacts.pushed(pulling)
         f = contacts.turned(pulling, f)
         if system.is_backward:
@@ -150,7 +151,7 @@ class ChainFactors(eqx.Module):
         if contacts.far is not None:
             far, k = contacts.far, len(system.compliance)
             here = contacts.is_closed[far.row, far.elements]
-            found = jnp.where(here, -multipliers[k : k + len(here)], -given[far.row, far.elements])
+            found = jnp.where(here, -multipliers[k::5], -given[far.row, far.elements])
             pressures = pressures.at[far.row].set(-given[far.row])
             pressures = pressures.at[far.row, far.elements].set(found, unique_indices=True)
             multipliers = multipliers[:k]
@@ -187,7 +188,7 @@ class ChainFactors(eqx.Module):
 @traced_once
 def factor_chain(system: ChainSystem) -> ChainFactors:
     """Factorisation from node to node, O(n)."""
-    whole, contacts, system = system, system.contacts, system.condensed()
+    whole, contacts, system = system, system.contacts.needed_first(), system.condensed()
     b, n = system.across.shape[-2:]
     dtype = system.diagonal.dtype
     middles, elements, negative = _eliminated(system)

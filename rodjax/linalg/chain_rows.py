@@ -99,6 +99,13 @@ class ContactRows(eqx.Module):
             moments = moments + self.inner.turned(pressures[self.inner.rows])
         return moments if self.far is None else moments + self.far.turned(pressures[self.far.row])
 
+    def needed_first(self) -> "ContactRows":
+        """Of those between elements first the ones that are closed or have curvature."""
+        if self.far is None:
+            return self
+        is_closed = self.is_closed[self.far.row, self.far.elements]
+        return dataclasses.replace(self, far=self.far.needed_first(is_closed))
+
     def condensed(self, system: "ChainSystem") -> "ChainSystem":
         """The system with what closed contacts add to its stiffness, but for those between elements."""
         weights = jnp.where(self.is_closed, 1 / self.contact_compliance, 0.0)

@@ -6,6 +6,7 @@ where a rod ends in it, of these motions alone.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,8 +24,11 @@ from rodjax.linalg.chain import ChainSystem
 from rodjax.linalg.chain_factors import factor_chain
 from rodjax.linalg.unilateral import Unilateral, closed_softly, with_pressures, with_slips, work
 from rodjax.programs.stacks import of_each
-from rodjax.solving.coupling import Coupling, EndContacts, sliding_along, solved_with_columns
+from rodjax.solving.coupling import Coupling, EndContacts, sliding_along
 from rodjax.solving.rod_contact import Columns
+
+# Of so many contacts with other rods columns are solved side by side.
+AT_A_TIME = 4
 
 
 class RodsInContact(eqx.Module):
@@ -79,12 +83,15 @@ class RodsInContact(eqx.Module):
 
     def touched(self, columns: Columns, pressures: Float[Array, "c"]) -> "RodsInContact":
         """By other rods, whose pressures are among the loads so far."""
-        gaps = columns.gaps(len(pressures))
-        f, c, first = (
-            self.f - gaps.rotation @ pressures,
-            self.c - gaps.rows @ pressures,
-            self.first + gaps.ends @ pressures,
-        )
+
+        def of_rod(columns: Columns, system: ChainSystem, f: Array, c: Array, first: Array):
+            border, contacts, nodes, gaps = system.split(c)
+            nodes -= columns.rows.pushed_by(0, pressures, len(nodes))
+            c = jnp.concatenate([part.reshape(-1) for part in (border, contacts, nodes, gaps)])
+            first = first.at[:12].add(columns.ends[:, 0] @ pressures)
+            return f - columns.rows.turned_by(0, pressures, f.shape[1]), c, first
+
+        f, c, first = of_each(of_rod)(columns, self.system, self.f, self.c, self.first)
         return dataclasses.replace(self, f=f, c=c, first=first, columns=columns)
 
     @property
@@ -146,18 +153,40 @@ def moved_by(
     return found
 
 
+class Touched(NamedTuple):
+    """Rods eliminated to their contacts with other rods: what is left for these, stiffness, how it changes as the rods
+    are moved, and forces; and solutions by the columns of these.
+    """
+
+    stiffness: Float[Array, "k 5c 5c"]
+    by_moves: Float[Array, "k 5c 12+a"]
+    force: Float[Array, "k 5c"]
+    by_columns: tuple[Float[Array, "k b 5c m"], Float[Array, "k 5c j"]]
+
+
 class Eliminated(NamedTuple):
     """Rods with some contacts closed, under a shift: whether they have a minimum, negative eigenvalues, solutions
     without what moves them and by that, and what is left for it: stiffness, and forces. After the motions of the ends
-    stand the arclengths of sliding clips, then the unknowns of contacts with other rods.
+    stand the arclengths of sliding clips. `touched`: `None` without contacts with other rods.
     """
 
     is_minimum: Bool[Array, "k"]
     negative: Int[Array, "k"]
-    motion: tuple[Array, Array]
-    by_motions: tuple[Array, Array]
-    stiffness: Float[Array, "k 12+a+z 12+a+z"]
-    force: Float[Array, "k 12+a+z"]
+    motion: tuple[Float[Array, "k b m"], Float[Array, "k j"]]
+    by_moves: tuple[Float[Array, "k b 12+a m"], Float[Array, "k 12+a j"]]
+    stiffness: Float[Array, "k 12+a 12+a"]
+    force: Float[Array, "k 12+a"]
+    touched: Touched | None
+
+    def moved(self, q: Float[Array, "k 12+a"], between: Float[Array, "5c"] | None) -> tuple[Array, Array]:
+        """The solutions, with what moves the rods."""
+        (x, y), (x_by, y_by) = self.motion, self.by_moves
+        x, y = x - jnp.einsum("kbrm,kr->kbm", x_by, q), y - jnp.einsum("krj,kr->kj", y_by, q)
+        if self.touched is None:
+            return x, y
+        assert between is not None
+        x_by, y_by = self.touched.by_columns
+        return x - jnp.einsum("kbrm,r->kbm", x_by, between), y - jnp.einsum("krj,r->kj", y_by, between)
 
 
 def _of_gaps(system: ChainSystem, coupling: Coupling) -> Float[Array, "r n+1 12+a"]:
@@ -168,8 +197,15 @@ def _of_gaps(system: ChainSystem, coupling: Coupling) -> Float[Array, "r n+1 12+
 
 
 def eliminated(
-    rods: RodsInContact, is_closed: Array, trial: Array, contact_compliance: Array, shift: Float[Array, "k"]
+    rods: RodsInContact,
+    is_closed: Array,
+    trial: Array,
+    contact_compliance: Array,
+    shift: Float[Array, "k"],
+    needed: Int[Array, ""] | None = None,
 ) -> Eliminated:
+    """`needed`: so many of the contacts with other rods, from the first one on, have columns."""
+
     def of_rod(
         rod: RodsInContact, is_closed: Array, closed_end: Array, trial: Array, contact_compliance: Array, shift: Array
     ) -> Eliminated:
@@ -191,18 +227,17 @@ def eliminated(
         force = (-rod.first).at[:12].add(jnp.einsum("rni,rn->i", of_ends, rod.contacts.pressures))
         slides = np.arange(12, moves)
         second = second.at[slides, slides].add(shift)
-        if rod.columns is not None:
-            of_gradient = jnp.concatenate([of_gradient, rod.columns.rotation], axis=2)
-            of_constraints = jnp.concatenate([of_constraints, rod.columns.rows], axis=1)
-            by_rotations = jnp.concatenate([by_rotations, rod.columns.rotation], axis=2)
-            by_multipliers = jnp.concatenate([by_multipliers, rod.columns.rows], axis=1)
-            count = rod.columns.ends.shape[1]
-            force, second = jnp.pad(force, (0, count)), jnp.pad(second, (0, count))
-            second = second.at[:12, moves:].set(rod.columns.ends).at[moves:, :12].set(rod.columns.ends.T)
-        (x, y), by_motions = solved_with_columns(factors.solve_softly, (f, c), (of_gradient, of_constraints))
-        stiffness = second - jnp.einsum("bmi,bmj->ij", by_rotations, by_motions[0])
-        stiffness -= by_multipliers.T @ by_motions[1]
-        force -= jnp.einsum("bmi,bm->i", by_rotations, x) + by_multipliers.T @ y
+        right = jnp.concatenate([f[..., None], of_gradient], 2), jnp.concatenate([c[:, None], of_constraints], 1)
+        if rod.columns is None:
+            touched, (x, y) = None, jax.vmap(factors.solve_softly, (-1, -1), (1, 0))(*right)
+        else:
+            assert needed is not None
+            (x, y), by_columns, times = _solved_in_pieces(factors.solve_softly, system, right, rod.columns, needed)
+            ends = rod.columns.ends.T.reshape(-1, 12)
+            by_moves = (-times[:, 1 : 1 + moves]).at[:, :12].add(ends)
+            touched = Touched(-times[:, 1 + moves :], by_moves, -times[:, 0], by_columns)
+        lost = jnp.einsum("bmi,brm->ir", by_rotations, x) + by_multipliers.T @ y.T
+        stiffness, force = second - lost[:, 1:], force - lost[:, 0]
         # Contacts of the bodies have no unknowns of the rod.
         rates = jnp.where(closed_end[..., None], at_ends.rates, 0.0)
         pressures = at_ends.pressures - at_ends.gaps / contact_compliance
@@ -210,7 +245,8 @@ def eliminated(
         pushed = jnp.einsum("oei,oe->ei", rates, pressures)
         stiffness = stiffness.at[:12, :12].add(jax.scipy.linalg.block_diag(*stiff))
         force = force.at[:12].add(pushed.reshape(12))
-        return Eliminated(factors.is_minimum, factors.negative, (x, y), by_motions, stiffness, force)
+        motion, by_moves = (x[:, 0], y[0]), (x[:, 1:], y[1:])
+        return Eliminated(factors.is_minimum, factors.negative, motion, by_moves, stiffness, force, touched)
 
     closed_rods, closed_ends = rods.split(is_closed)
     trials, _ = rods.split(trial)
@@ -219,6 +255,53 @@ def eliminated(
     # Of a rod without obstacles there is none.
     soft = of_rods[:, 0, 0] if of_rods.size else rods.system.contacts.contact_compliance
     return of_each(of_rod)(rods, closed_rods, closed_ends, trials, jnp.broadcast_to(soft, (count,)), shift)
+
+
+def _solved_in_pieces(
+    solve: Callable[[Array, Array], tuple[Array, Array]],
+    system: ChainSystem,
+    right: tuple[Float[Array, "b m r"], Float[Array, "j r"]],
+    columns: Columns,
+    needed: Int[Array, ""],
+) -> tuple[tuple[Array, Array], tuple[Array, Array], Float[Array, "5c r+5c"]]:
+    """Solutions for right sides, then for the columns of the first contacts, of others zero, and what these columns do
+    to all of them: piece by piece, in one loop.
+    """
+    m, (j, r), dtype, count = right[0].shape[1], right[1].shape, right[1].dtype, columns.ends.shape[-1]
+    piece = 5 * AT_A_TIME
+    first, others = -(-r // piece), -(-count // AT_A_TIME)  # pieces
+
+    def wider(part: Array, size: int) -> Array:
+        return jnp.pad(part, [(0, 0)] * (part.ndim - 1) + [(0, size - part.shape[-1])])
+
+    # After the last right side there is a piece of nothing.
+    all_f, all_c = (wider(side, piece * (first + 1)) for side in right)
+    all_rows = jax.tree.map(lambda part: wider(part, AT_A_TIME * others), columns.rows)
+    is_column = jnp.ones((5, AT_A_TIME), dtype)
+
+    def of_piece(number: Int[Array, ""], found: tuple[Array, ...]) -> tuple[Array, ...]:
+        at = piece * jnp.minimum(number, first)
+        f, c = (jax.lax.dynamic_slice_in_dim(side, at, piece, -1) for side in (all_f, all_c))
+        at = AT_A_TIME * jnp.maximum(number - first, 0)
+        rows = jax.tree.map(lambda part: jax.lax.dynamic_slice_in_dim(part, at, AT_A_TIME, -1), all_rows)
+        by_rotation, by_position = rows.columns(jnp.where(number < first, 0.0, is_column), m)
+        before = j - by_position[0].size - 3 * (len(system.held) - 1)
+        by_position = jnp.pad(by_position.reshape(piece, -1), ((0, 0), (before, j - before - by_position[0].size)))
+        x, y = jax.vmap(solve, (1, 0), (1, 0))(jnp.moveaxis(f, -1, 1) + by_rotation, c.T + by_position)
+        times = columns.times(x, jax.vmap(system.split)(y)[2])
+        at = piece * number
+        return tuple(
+            jax.lax.dynamic_update_slice_in_dim(whole, part, at, axis)
+            for whole, part, axis in zip(found, (x, y, times), (1, 0, 1), strict=True)
+        )
+
+    size = piece * (first + others)
+    blank = jnp.zeros((len(all_f), size, m), dtype), jnp.zeros((size, j), dtype)
+    pieces = first + (needed + AT_A_TIME - 1) // AT_A_TIME
+    x, y, times = jax.lax.fori_loop(0, pieces, of_piece, (*blank, jnp.zeros((5 * count, size), dtype)))
+    of_columns = slice(piece * first, piece * first + 5 * count)
+    times = jnp.concatenate([times[:, :r], times[:, of_columns]], axis=1)
+    return (x[:, :r], y[:r]), (x[:, of_columns], y[of_columns]), times
 
 
 def along_rod(

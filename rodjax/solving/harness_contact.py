@@ -23,12 +23,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from rodjax.linalg.small_matrices import inverse_matrix, negative_count, solved_where_regular
+from rodjax.linalg.chain import ChainSystem
+from rodjax.linalg.far_rows import SIGNS
+from rodjax.linalg.small_matrices import solved_where_regular
 from rodjax.linalg.unilateral import Unilateral, sought
 from rodjax.programs.stacks import of_each
 from rodjax.solving.contact_elimination import Eliminated, RodsInContact, along_rod, eliminated
 from rodjax.solving.newton import MAX_FACTORS, SHIFT_GROWTH
-from rodjax.solving.rod_contact import Between, BetweenStep
+from rodjax.solving.rod_contact import Between, BetweenStep, Columns, Needed
 
 
 class BodyContacts(eqx.Module):
@@ -173,21 +175,18 @@ class ContactModel(eqx.Module):
         *of_groups, of_pairs = self.split(is_closed)
         *softness, soft_pairs = self.split(contact_compliance)
         *trials, _ = self.split(trial)
-        if self.between is None:
+        needed = None if self.between is None else self.between.first_needed(of_pairs, soft_pairs)
+        if needed is None:
             each = zip(self.groups, self.least_shifts, of_groups, trials, softness, memory.shifts, strict=True)
             all_found, shifts = zip(*(self._regularized(*given) for given in each), strict=True)
         else:
-            closed = self._with_closed(of_pairs)
-            all_found, shifts, touching = self._together(
-                closed, of_groups, trials, softness, (of_pairs, soft_pairs), memory.shifts
-            )
+            all_found, shifts, touching = self._together(needed, of_groups, trials, softness, memory.shifts)
         is_minimum = jnp.array(True) if touching is None else touching.is_minimum
         for rods, found in zip(self.groups, all_found, strict=True):
             if touching is None:
                 is_minimum &= jnp.all(found.is_minimum)
-            by_q, moves = rods.by_q, rods.by_q.shape[1]
-            stiffness += jnp.einsum("k,kiq,kij,kjp->qp", rods.shares, by_q, found.stiffness[:, :moves, :moves], by_q)
-            force += jnp.einsum("k,kiq,ki->q", rods.shares, by_q, found.force[:, :moves])
+            stiffness += jnp.einsum("k,kiq,kij,kjp->qp", rods.shares, rods.by_q, found.stiffness, rods.by_q)
+            force += jnp.einsum("k,kiq,ki->q", rods.shares, rods.by_q, found.force)
         if touching is not None:
             stiffness -= touching.by_bodies.T @ touching.inverse @ touching.by_bodies
             force -= touching.by_bodies.T @ touching.inverse @ touching.force
@@ -209,47 +208,36 @@ class ContactModel(eqx.Module):
         if not self.has_symmetry:
             values = values if self.may_reverse else jnp.abs(values)
             q = solved_where_regular(stiffness, force, values, self.least, q)
-        motions = []
         between = None if touching is None else touching.inverse @ (touching.force - touching.by_bodies @ q)
-        for rods, found in zip(self.groups, all_found, strict=True):
-            moved = rods.moved(q)
-            if rods.columns is not None:
-                assert between is not None
-                moved = jnp.concatenate([moved, jnp.tile(between[None], (len(moved), 1))], axis=1)
-            by_moves = (jnp.einsum("k...i,ki->k...", by, moved) for by in found.by_motions)
-            motions.append(tuple(jax.tree.map(jnp.subtract, found.motion, tuple(by_moves))))
+        each = zip(self.groups, all_found, strict=True)
+        motions = tuple(found.moved(rods.moved(q), between) for rods, found in each)
+        if between is not None and needed is not None:
+            between = needed.of_model(between)
         negative = tuple(found.negative for found in all_found)
         if touching is not None:
             # What contacts take from them counts with the first group.
             negative = (negative[0].at[0].add(touching.excess), *negative[1:])
         below = jnp.where(jnp.any(is_below), jnp.sum(is_below), memory.below)
-        return is_minimum, (tuple(motions), q, between), Memory(tuple(shifts), negative, reversal, below, push)
-
-    def _with_closed(self, is_closed: Bool[Array, "c"]) -> list[RodsInContact]:
-        """The rods with the columns of closed contacts between them."""
-        found = []
-        for rods in self.groups:
-            columns = None if rods.columns is None else of_each(lambda columns: columns.where(is_closed))(rods.columns)
-            found.append(dataclasses.replace(rods, columns=columns))
-        return found
+        return is_minimum, (motions, q, between), Memory(tuple(shifts), negative, reversal, below, push)
 
     def _together(
         self,
-        groups: list[RodsInContact],
+        contacts: Needed,
         is_closed: list[Array],
         trials: list[Array],
         contact_compliance: list[Array],
-        pairs: tuple[Array, Array],
         shifts: tuple[Float[Array, "k"], ...],
     ) -> tuple[list[Eliminated], tuple[Float[Array, "k"], ...], "_Touching"]:
-        """Stiffer until all rods and their contacts have a minimum between held bodies. `pairs`: which contacts between
-        rods are closed, and their compliance.
-        """
+        """Stiffer until all rods and their contacts with one another have a minimum between held bodies."""
+        groups = []
+        for rods in self.groups:
+            columns = rods.columns and of_each(lambda columns: columns.needed(contacts))(rods.columns)
+            groups.append(dataclasses.replace(rods, columns=columns))
 
         def of_all(shifts: tuple[Array, ...]) -> tuple[list[Eliminated], _Touching]:
             each = zip(groups, is_closed, trials, contact_compliance, shifts, strict=True)
-            found = [eliminated(*given) for given in each]
-            return found, self._touching(found, *pairs)
+            found = [eliminated(*given, contacts.total) for given in each]
+            return found, self._touching(found, contacts)
 
         if not self.may_reverse:
             found, touching = of_all(shifts)
@@ -274,30 +262,25 @@ class ContactModel(eqx.Module):
         )
         return found, shifts, touching
 
-    def _touching(self, all_found: list[Eliminated], is_closed: Array, contact_compliance: Array) -> "_Touching":
-        between = self.between
-        assert between is not None
-        compliances = between.compliances(is_closed, contact_compliance)
-        matrix, by_bodies, negative = -jnp.diag(compliances), 0.0, jnp.zeros((), int)
-        given = jnp.where(is_closed, contact_compliance * between.pressures - between.gaps, 0.0)
-        force = jnp.pad(given, (0, 4 * len(given)))
+    def _touching(self, all_found: list[Eliminated], contacts: Needed) -> "_Touching":
+        matrix, by_bodies, force = -jnp.diag(contacts.compliances), 0.0, contacts.right
+        negative = jnp.zeros((), int)
         for rods, found in zip(self.groups, all_found, strict=True):
             negative += jnp.sum(found.negative)
-            if rods.columns is None:
+            if found.touched is None:
                 continue
-            moves = rods.by_q.shape[1]
-            matrix += jnp.einsum("k,kzy->zy", rods.shares, found.stiffness[:, moves:, moves:])
-            by_bodies += jnp.einsum("k,kzi,kiq->zq", rods.shares, found.stiffness[:, moves:, :moves], rods.by_q)
-            force += jnp.einsum("k,kz->z", rods.shares, found.force[:, moves:])
-        excess = negative_count(jax.lax.stop_gradient(matrix)[None]) - between.positive
+            matrix += jnp.einsum("k,kzy->zy", rods.shares, found.touched.stiffness)
+            by_bodies += jnp.einsum("k,kzi,kiq->zq", rods.shares, found.touched.by_moves, rods.by_q)
+            force += jnp.einsum("k,kz->z", rods.shares, found.touched.force)
+        inverse, excess = contacts.inverse(matrix)
         is_minimum = (negative + excess == 0) & jnp.isfinite(jnp.sum(matrix))
-        return _Touching(is_minimum, excess, inverse_matrix(matrix), jnp.asarray(by_bodies), force)
+        return _Touching(is_minimum, excess, inverse, jnp.asarray(by_bodies), force)
 
     def opening(self, motion: Any) -> Array:
         of_rods, q, _ = motion
         rows = [rods.opening(each, q) for rods, each in zip(self.groups, of_rods, strict=True)]
         if self.between is not None:
-            rows.append(self.rates(motion)[: len(self.between.gaps)])
+            rows.append(self.rates(motion)[::5])
         return self.rows(rows)
 
     def rates(self, motion: Any) -> Float[Array, "5c"]:
@@ -306,7 +289,11 @@ class ContactModel(eqx.Module):
         total = 0.0
         for rods, (x, y) in zip(self.groups, of_rods, strict=True):
             if rods.columns is not None:
-                total += rods.shares @ rods.columns.rates(x, y, rods.moved(q))
+
+                def of_rod(columns: Columns, system: ChainSystem, x: Array, y: Array, moved: Array) -> Array:
+                    return columns.rates(x, system.split(y)[2], moved)
+
+                total += rods.shares @ of_each(of_rod)(rods.columns, rods.system, x, y, rods.moved(q))
         return jnp.asarray(total)
 
     def along(self, motion: Any, change: Any, memory: Memory) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -319,8 +306,8 @@ class ContactModel(eqx.Module):
             slope += jnp.sum(rods.shares * slopes)
             curvature += jnp.sum(rods.shares * curvatures)
         if self.between is not None:
-            count, signs = len(self.between.gaps), self.between.signs.astype(slope.dtype)
-            here, ahead = self.rates(motion)[count:], self.rates(change)[count:]
+            signs = jnp.asarray(SIGNS, slope.dtype)[None]
+            here, ahead = (self.rates(each).reshape(-1, 5)[:, 1:] for each in (motion, change))
             slope += jnp.sum(signs * here * ahead)
             curvature += jnp.sum(signs * ahead**2)
         return slope, curvature
@@ -383,7 +370,7 @@ def contact_step(model: ContactModel, shifts: tuple[Float[Array, "k"], ...], dam
         # Of closed ones the multipliers: by the gaps they would be off by rounding over a small compliance.
         of_pairs = found[-len(between.gaps) :]
         is_known = (of_pairs > 0) & end.is_done
-        found = found.at[-len(between.gaps) :].set(jnp.where(is_known, -multipliers[: len(between.gaps)], of_pairs))
+        found = found.at[-len(between.gaps) :].set(jnp.where(is_known, -multipliers[::5], of_pairs))
     change = contacts.allowed(found) - contacts.pressures
     motions, at_ends = [], []
     *changes, of_pairs = model.split(change)
@@ -402,5 +389,5 @@ def contact_step(model: ContactModel, shifts: tuple[Float[Array, "k"], ...], dam
         q,
         end.memory.below,
         end.is_minimum & end.is_done,
-        None if between is None else BetweenStep(between, of_pairs, model.rates(end.motion)[: len(of_pairs)]),
+        None if between is None else BetweenStep(between, of_pairs, model.rates(end.motion)[::5]),
     )

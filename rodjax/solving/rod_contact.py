@@ -7,6 +7,7 @@ their systems (`columns_of`): gradients of gaps and vectors of their curvature, 
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -31,7 +32,8 @@ from rodjax.discretization.rod_pairs import (
     with_pair_wells,
 )
 from rodjax.linalg.chain import ChainSystem
-from rodjax.linalg.far_rows import SIGNS
+from rodjax.linalg.far_rows import SIGNS, NodeRows, compliances_of
+from rodjax.linalg.small_matrices import inverse_matrix, negative_count
 from rodjax.model.loads import ContactLoads
 from rodjax.programs.stacks import of_each
 from rodjax.solving.coupling import Coupling
@@ -44,6 +46,10 @@ MOST_BETWEEN = 64
 # Compliance of contacts in the model of a step [L^3/EI]. Where the cells of two elements overlap, both may have a
 # contact at one place; what one of them lacks to touch is below 1e-8 L.
 CONTACT_COMPLIANCE = 1e-9
+# What is left of them is inverted with the first so many, or with all; of each contact so many columns have a positive
+# compliance.
+FEW = (8,)
+POSITIVE = 1 + int(np.sum(SIGNS > 0))
 
 
 class Pairs(NamedTuple):
@@ -163,19 +169,57 @@ class Between(NamedTuple):
     def contact_compliance(self) -> Float[Array, "c"]:
         return jnp.full_like(self.gaps, CONTACT_COMPLIANCE)
 
-    @property
-    def signs(self) -> np.ndarray:
-        """Compliances of the columns of curvature."""
-        return np.repeat(SIGNS, len(self.gaps))
+    def first_needed(self, is_closed: Bool[Array, "c"], contact_compliance: Float[Array, "c"]) -> "Needed":
+        """With these closed."""
+        is_needed = is_closed | (self.pressures > 0)
+        order = jnp.argsort(~is_needed)
+        gaps, pressures, is_closed, contact_compliance = (
+            row[order] for row in (self.gaps, self.pressures, is_closed, contact_compliance)
+        )
+        return Needed(gaps, pressures, is_closed, contact_compliance, order, jnp.sum(is_needed))
 
-    def compliances(self, is_closed: Bool[Array, "c"], contact_compliance: Float[Array, "c"]) -> Float[Array, "5c"]:
+
+class Needed(NamedTuple):
+    """The contacts of a model, first those that are closed or have curvature, `total` of them; `order`: their numbers
+    in the model.
+    """
+
+    gaps: Float[Array, "c"]
+    pressures: Float[Array, "c"]
+    is_closed: Bool[Array, "c"]
+    contact_compliance: Float[Array, "c"]
+    order: Int[Array, "c"]
+    total: Int[Array, ""]
+
+    @property
+    def compliances(self) -> Float[Array, "5c"]:
         """Of all columns; an open contact is a number by itself."""
-        return jnp.concatenate([jnp.where(is_closed, contact_compliance, 1.0), self.signs.astype(self.gaps.dtype)])
+        return compliances_of(jnp.where(self.is_closed, self.contact_compliance, 1.0))
 
     @property
-    def positive(self) -> int:
-        """How many of them are positive."""
-        return len(self.gaps) + int(np.sum(self.signs > 0))
+    def right(self) -> Float[Array, "5c"]:
+        """The right sides of their rows."""
+        given = jnp.where(self.is_closed, self.contact_compliance * self.pressures - self.gaps, 0.0)
+        return jnp.zeros((len(given), 5), given.dtype).at[:, 0].set(given).reshape(-1)
+
+    def inverse(self, matrix: Float[Array, "5c 5c"]) -> tuple[Float[Array, "5c 5c"], Int[Array, ""]]:
+        """Of a matrix of all columns, and by how many more of its eigenvalues than of compliances are negative. Each
+        column that is not needed is a number by itself.
+        """
+
+        def with_first(count: int) -> tuple[Array, Array]:
+            first = slice(5 * count)
+            part = matrix[first, first]
+            inverse = jnp.diag(1 / jnp.diagonal(matrix)).at[first, first].set(inverse_matrix(part))
+            return inverse, negative_count(jax.lax.stop_gradient(part)[None]) - POSITIVE * count
+
+        few = [count for count in FEW if count < len(self.gaps)]
+        branches = [functools.partial(with_first, count) for count in (*few, len(self.gaps))]
+        return jax.lax.switch(jnp.sum(self.total > np.array(few, int)), branches)
+
+    def of_model(self, multipliers: Float[Array, "5c"]) -> Float[Array, "5c"]:
+        """As the contacts stand in the model."""
+        return multipliers.reshape(-1, 5)[jnp.argsort(self.order)].reshape(-1)
 
 
 class BetweenStep(NamedTuple):
@@ -201,30 +245,32 @@ class BetweenStep(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Of rods of one group what their gaps and the vectors of curvature are by the unknowns of their systems, and by
-    the motions of their ends, in the units of each system: [gaps, then the four vectors of all contacts].
+    """Of a rod what its gaps and the vectors of curvature are by the rotations and positions of its nodes, and by the
+    motions of its ends, in the units of its system.
     """
 
-    rotation: Float[Array, "k b m 5c"]
-    rows: Float[Array, "k j 5c"]
-    ends: Float[Array, "k 12 5c"]
+    rows: NodeRows
+    ends: Float[Array, "12 5 c"]
 
-    def gaps(self, count: int) -> "Columns":
-        return Columns(*(part[..., :count] for part in self))
-
-    def where(self, is_closed: Bool[Array, "c"]) -> "Columns":
-        """Without those of open contacts."""
-        kept = jnp.concatenate([is_closed, jnp.ones(4 * len(is_closed), bool)])
-        return Columns(*(jnp.where(kept, part, 0.0) for part in self))
+    def needed(self, contacts: Needed) -> "Columns":
+        """In their order, without the gaps of open ones."""
+        kept = contacts.is_closed[None] | (np.arange(5) > 0)[:, None]
+        by_rotation, by_position, nodes, ends = (
+            part[..., contacts.order]
+            for part in (self.rows.by_rotation, self.rows.by_position, self.rows.nodes, self.ends)
+        )
+        by_rotation, by_position = (jnp.where(kept[:, None, None], part, 0.0) for part in (by_rotation, by_position))
+        return Columns(NodeRows(by_rotation, by_position, nodes), jnp.where(kept[None], ends, 0.0))
 
     def rates(
-        self, x: Float[Array, "k b m"], y: Float[Array, "k j"], of_ends: Float[Array, "k 12"]
-    ) -> Float[Array, "k 5c"]:
-        return (
-            jnp.einsum("kbmz,kbm->kz", self.rotation, x)
-            + jnp.einsum("kjz,kj->kz", self.rows, y)
-            + jnp.einsum("kiz,ki->kz", self.ends, of_ends)
-        )
+        self, x: Float[Array, "b m"], u: Float[Array, "n+1 3"], of_ends: Float[Array, "12"]
+    ) -> Float[Array, "5c"]:
+        """As the rod turns, and its nodes and ends move."""
+        return self.times(x[:, None], u[None])[:, 0] + jnp.einsum("izc,i->cz", self.ends, of_ends).reshape(-1)
+
+    def times(self, x: Float[Array, "b r m"], u: Float[Array, "r n+1 3"]) -> Float[Array, "5c r"]:
+        """As the rod turns, and its nodes move, in r ways."""
+        return self.rows.times(jnp.ones(self.ends.shape[1:], x.dtype), x, u)
 
 
 def curves_of(forms: NodalForm, points: Any, units: Any, length: Float[Array, ""], origin: Float[Array, "3"]) -> Curve:
@@ -361,13 +407,13 @@ def columns_of(
     free: Float[Array, "k m"],
     scales: tuple[Float[Array, "k"], Float[Array, "k"]],
 ) -> Columns:
-    """Of the rods of a group. `free`: 0 where clamps hold rotations, else 1; `scales`: the unit of length and that of
-    energy of each rod, in those of the assembly.
+    """Of the rods of a group, stacked. `free`: 0 where clamps hold rotations, else 1; `scales`: the unit of length and
+    that of energy of each rod, in those of the assembly.
     """
     lengths, shares = scales
     (k, b), nodes = system.diagonal.shape[:2], system.held.shape[1]
     count = sum(chosen.nodes.shape[1] for chosen in all_chosen)
-    by_node, first = jnp.zeros((k, 5, count, 6, nodes), lengths.dtype), 0
+    at, vectors, first = jnp.zeros((k, 2, count), int), jnp.zeros((k, 5, 6, 2, count), lengths.dtype), 0
     for pairs, chosen in zip(all_pairs, all_chosen, strict=True):
         numbers = first + np.arange(chosen.nodes.shape[1])
         first += len(numbers)
@@ -376,19 +422,17 @@ def columns_of(
                 continue
             # Rods of other groups are dropped: they have no place here.
             rods = jnp.asarray(places - begins[groups.index(group)])[chosen.pair]
-            rods, at = jnp.where((rods >= 0) & (rods < k), rods, k), chosen.nodes[of_side]
-            vectors = chosen.vectors[:, :, of_side].transpose(2, 3, 0, 1)
-            by_node = by_node.at[rods[None], :, numbers[None], :, at].add(vectors)
-    by_node = by_node.reshape(k, 5 * count, 6, nodes) / shares[:, None, None, None]
-    by_rotation = by_node[:, :, :b]
-    by_position = lengths[:, None, None, None] * by_node[:, :, 3:]
-    at_ends = jnp.concatenate([by_rotation, by_position], axis=2)[..., np.array([0, -1])]
+            rods = jnp.where((rods >= 0) & (rods < k), rods, k)
+            at = at.at[rods, :, numbers].set(chosen.nodes[of_side].T)
+            vectors = vectors.at[rods, ..., numbers].set(jnp.moveaxis(chosen.vectors[:, :, of_side], -1, 0))
+    vectors /= shares[:, None, None, None, None]
+    by_rotation, by_position = vectors[:, :, :b], lengths[:, None, None, None, None] * vectors[:, :, 3:]
+    is_end = (at[:, None] == np.array([0, nodes - 1])[None, :, None, None]).astype(vectors.dtype)
+    at_ends = jnp.einsum("kziqc,keqc->kezic", jnp.concatenate([by_rotation, by_position], axis=2), is_end)
     assert coupling.of_nodes is not None
-    ends = jnp.einsum("kzie,keij->kejz", at_ends, coupling.of_nodes).reshape(k, 12, -1)
-    rotation = jnp.zeros((k, b, 2 * nodes - 1, 5 * count), by_node.dtype)
-    rotation = rotation.at[:, :, ::2].set(by_rotation.transpose(0, 2, 3, 1) * free[:, None, ::2, None])
-    moving = jnp.where(system.held[:, None, :, None], 0.0, by_position.transpose(0, 1, 3, 2))
-    # Among the multipliers of the system: border, contacts with obstacles, nodes, elements.
-    before = system.compliance.shape[1] + system.contacts.is_closed[0].size
-    moving = jnp.swapaxes(moving.reshape(k, 5 * count, -1), 1, 2)
-    return Columns(rotation, jnp.pad(moving, ((0, 0), (before, 3 * (nodes - 1)), (0, 0))), ends)
+    ends = jnp.einsum("kezic,keij->kejzc", at_ends, coupling.of_nodes).reshape(k, 12, 5, count)
+    turns, moves = (
+        jnp.take_along_axis(part, at.reshape(k, -1), axis=1).reshape(at.shape)[:, None, None]
+        for part in (free[:, ::2], jnp.where(system.held, 0.0, 1.0).astype(vectors.dtype))
+    )
+    return Columns(NodeRows(by_rotation * turns, by_position * moves, at), ends)

@@ -1,5 +1,7 @@
 """Rods of a harness that touch one another: against one rod under a point force, balance, and differences."""
 
+import dataclasses
+
 import h5py
 import jax
 import jax.numpy as jnp
@@ -9,9 +11,12 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy.optimize import brentq
 
 import rodjax
-from rodjax import Body, Clamp, Harness, Joint, Newton, Pin, Plane, PointForce, Rod, Scene, plot
+from rodjax import Body, Clamp, Guess, Harness, Joint, Newton, Pin, Plane, PointForce, Rod, Scene, plot
 from rodjax.analysis.sensitivity import moved
+from rodjax.discretization.first_shape import first_shape
 from rodjax.linalg.far_rows import SIGNS
+from rodjax.model.scene import nondimensional
+from rodjax.solving.first_sides import on_their_sides
 from rodjax.solving.rod_contact import Between, pairs_of
 from rodjax.solving.rod_contact_results import touching_rods
 
@@ -425,3 +430,42 @@ def test_contacts_are_solved_with_those_that_are_needed_first(closed):
     whole = matrix(np.arange(count))
     np.testing.assert_allclose(found, np.linalg.solve(whole, given.reshape(-1)), atol=1e-12)
     assert excess == np.sum(np.linalg.eigvalsh(whole) < 0) - np.sum(compliances > 0)
+
+
+def hammocks() -> Harness:
+    """Two cables that cross at right angles, of which the upper one is so long that it would sag through the other."""
+    scenes = {}
+    for name, frame, height, length in (("upper", ALONG, 0.05, 1.2), ("lower", ACROSS, 0.0, 1.02)):
+        half, up = 0.5 * LENGTH * np.asarray(frame)[:, 2], np.array([0, 0, height])
+        cable = Rod.circular(length, RADIUS, YOUNGS_MODULUS, poisson_ratio=0.5, density=1200)
+        scenes[name] = Scene(cable, Clamp(up - half, frame), Clamp(up + half, frame), gravity=(0, 0, -9.81))
+    return Harness(scenes, contact=True)
+
+
+def test_cables_begin_on_the_side_of_the_line_between_their_ends():
+    """The upper one hangs over the lower one, also where its own first shape would have begun below."""
+    found = rodjax.solve(hammocks(), segments=8)
+    assert found.converged
+    assert found.stable
+    upper, lower = (np.asarray(found[name].nodes) for name in ("upper", "lower"))
+    assert upper[4, 2] - lower[4, 2] > 2 * RADIUS  # in the middle, where they cross
+    weight = 1200 * np.pi * RADIUS**2 * 9.81 * 1.2
+    pressed = float(np.sum(np.asarray(found.rod_contacts["upper", "lower"].forces)[:, 2]))
+    assert 0.1 * weight < abs(pressed) < weight
+
+
+def test_shapes_are_drawn_to_their_sides_where_they_must_be_and_can_be():
+    """By their heights where they cross; what passes as it is, and what a shape is given for, stays as it is."""
+    harness = hammocks()
+    upper, lower = on_their_sides(harness.scenes, harness.contact, (None, None))
+    assert lower is None
+    assert upper is not None
+    begin = np.asarray(first_shape(nondimensional(harness["lower"])[0], 64))
+    lowest = begin[32, 2] * float(harness["lower"].rod.length)
+    middle = np.asarray(upper.points)[32, 2]
+    assert 2 * RADIUS < middle - lowest < 0.05 + 0.2  # outside, and no higher than its own line
+    given = Guess(np.asarray(upper.points) - 1.0)
+    assert on_their_sides(harness.scenes, harness.contact, (given, None)) == (given, None)
+    apart = jax.tree.map(lambda leaf: leaf, harness["upper"])
+    apart = dataclasses.replace(apart, start=Pin((2, 0, 0.05)), end=Pin((3, 0, 0.05)))
+    assert on_their_sides([apart, harness["lower"]], harness.contact, (None, None)) == (None, None)

@@ -62,8 +62,8 @@ class Harness(eqx.Module):
     - `contact`: which rods, all with a radius, touch one another without friction: `False` for none, `True` for every
         pair that shares no joint, or pairs of their names, which share none either: there their ends meet. Each element
         touches another rod where it is nearest to it, at most 32 at a time between rods of two structures. No step of a
-        search leads a rod through another; on which side of one another they lie is that of their first shapes: between
-        the supports, of `guess`, or of the last step of a path.
+        search leads a rod through another; on which side of one another they lie is that of the lines between the
+        places that hold them, where these cross, of `guess`, or of the last step of a path.
 
     A rod touches the obstacles of its own scene, and a joint those of its rods at the places where these end in it,
     there without friction, unless a support of its own holds it in a direction. Without contact between rods one end

@@ -16,13 +16,14 @@ from rodjax.solving.assembly import Poses
 from rodjax.solving.description import places_told
 from rodjax.solving.equilibrium import is_here
 from rodjax.solving.first_poses import Shapes, first_poses
+from rodjax.solving.first_sides import on_their_sides
 from rodjax.solving.guess import Guess
 from rodjax.solving.harness_derivatives import differentiable_harness
 from rodjax.solving.harness_forces import no_pressures
 from rodjax.solving.harness_refinement import refined
 from rodjax.solving.harness_result import HarnessEquilibrium
 from rodjax.solving.harness_rods import clamped_rods
-from rodjax.solving.harness_start import solved_on_meshes
+from rodjax.solving.harness_start import at_poses, solved_on_meshes
 from rodjax.solving.implicit import not_differentiated
 from rodjax.solving.newton import Newton
 from rodjax.solving.options import DEFAULT_RTOL, check_single, checked_options, checked_strain_limit
@@ -62,6 +63,8 @@ def solve_harness(
         poses = Poses(bodies.position, bodies.frame)
     else:
         poses = first_poses(fixed, shapes) if earlier is None else _followed(fixed, earlier)
+    if earlier is None and fixed.contact:
+        shapes = on_their_sides(at_poses(fixed, poses), fixed.contact, shapes)
     kept = [None] * len(fixed) if earlier is None else earlier.segments
     counts = segments if isinstance(segments, list) else [segments] * len(fixed)
     all_options, tolerance = [], rtol

@@ -94,6 +94,11 @@ def _as_it_was(scene: Scene, group: Equilibrium, options: Options) -> tuple[Solv
     return (group.state, last_twist(group)) if fits(scene, one, options) else None
 
 
+def at_poses(harness: Harness, poses: Poses) -> list[Scene]:
+    """The scenes of its rods, with clamps in the place of joints."""
+    return [_at(scene, _bodies_of(harness, number), poses) for number, scene in enumerate(harness.scenes)]
+
+
 def _bodies_of(harness: Harness, number: int) -> tuple[int, int]:
     return joint_ends(harness.scenes[number], harness.joint_names)[0]
 
